@@ -10,9 +10,12 @@ import torch
 from near_cameras import LENS, error, filmed, quietly
 
 import kcs_torch as kt
+from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.rotation import rotation_angle
 from kcs_torch.methods.answer.finish import loose_lengths
 from kcs_torch.methods.perspective import calibrated, scene
 from kcs_torch.methods.perspective.parallel_image import image_noise
+from kcs_torch.methods.pkc.fixed_answer import SEE_OTHERS
 from kcs_torch.types import Intrinsics, Motion
 
 
@@ -88,6 +91,27 @@ def test_the_turn_that_is_told_is_that_of_the_cameras():
     for one in (found, *found.alternatives):
         turn = float(kt.functional.viewpoint_turn(one.cameras))
         assert one.diagnostics.viewpoint_turn == pytest.approx(turn, abs=1e-6)
+
+
+@pytest.mark.parametrize(("method", "most"), [("kcs", 9.5), ("pkc", 4.0)])
+def test_cameras_turn_with_the_trunk_that_refinement_found(method, most):
+    tracks, _ = filmed(yaw=60, turn=90, frames=45)
+    result = quietly(tracks, method=method, intrinsics=LENS)
+    true = complete_rotation(kt.data.walking_person(45, yaw=60, turn=90).cameras)
+    found = complete_rotation(result.cameras)
+    found = found @ kt.functional.nearest_rotation((found.mT @ true).sum(0))
+    assert float(rotation_angle(found, true).rad2deg().mean()) < most
+
+
+def test_no_more_alternatives_than_are_asked_for():
+    tracks, _ = filmed(frames=12)
+    assert quietly(tracks, intrinsics=LENS, alternatives=0).alternatives == ()
+
+
+def test_a_note_points_to_no_rivals_that_only_parallel_rays_had():
+    lens = (1500.0, 1500.0, 960.0, 540.0)
+    found = quietly(filmed(lens=lens)[0].frames(0, 1), intrinsics=lens)
+    assert found.alternatives == () and not any(SEE_OTHERS in note for note in found.diagnostics.notes)
 
 
 @pytest.mark.parametrize("method", ["kcs", "pkc"])

@@ -30,6 +30,8 @@ from kcs_torch.methods.perspective.view import View, lens_note, zoomed
 from kcs_torch.methods.pkc.answers import CLOSE, HEADING
 from kcs_torch.methods.pkc.fixed_answer import SEE_OTHERS, UNSIDED
 from kcs_torch.methods.pkc.near import SEEMS_NEAR
+from kcs_torch.methods.pkc.objective import usual_posture
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.types import Reconstruction, Tracks
 
 __all__ = ["assemble", "in_every_solution", "leaning", "noted", "timed"]
@@ -42,22 +44,34 @@ LEAN, ASIDE = 0.05, 0.1
 lens and a body that leans explain much the same image; and if the image's size is a guess as well."""
 
 
-def assemble(method: Method, tracks: Tracks, found: Found) -> Reconstruction:
-    """The best solution in the camera's frame, with those of the others that differ from it."""
+def assemble(method: Method, tracks: Tracks, found: Found, cameras: Tensor | None = None) -> Reconstruction:
+    """The best solution in the camera's frame, with those of the others that differ from it.
+
+    Args:
+        method: that lifted the tracks.
+        tracks: as they are in the image.
+        found: in them.
+        cameras: (T, 2, 3) that are known, or None.
+    """
     bodies, unit = found.bodies, found.scene.unit
-    keep: list[int] = []
+    most, keep = max(1, len(found.lifted[0].alternatives)), list[int]()
+    most = min(most, getattr(method, "alternatives", most))
     for k, depth in enumerate(bodies.depth):
         if keep and not bool(depth.isfinite().all() & bodies.distance[k].isfinite().all()):
             continue
         apart = [float((depth - bodies.depth[j]).square().mean().sqrt()) for j in keep]
-        if len(keep) <= max(1, len(found.lifted[0].alternatives)) and all(a > APART * unit for a in apart):
+        if len(keep) <= most and all(a > APART * unit for a in apart):
             keep.append(k)
-    made = [_in_camera(method, tracks, found, k) for k in keep]
+    made = [_in_camera(method, tracks, found, k, cameras) for k in keep]
+    if has_trunk(tracks.skeleton) and not found.flat:
+        signs = found.scene.uncertain(bodies[torch.tensor(keep, device=bodies.energy.device)])
+        facts = made[0].diagnostics
+        made[0] = replace(made[0], diagnostics=replace(facts, notes=(*signs, *facts.notes)))
     return replace(made[0], alternatives=tuple(made[1:]))
 
 
-def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstruction:
-    """Solution number ``k`` in the camera's frame."""
+def _in_camera(method: Method, tracks: Tracks, found: Found, k: int, cameras: Tensor | None) -> Reconstruction:
+    """Solution number ``k`` in the camera's frame, whose ``cameras`` (T, 2, 3) may be known."""
     bodies, body = found.bodies, tracks.skeleton
     lifted = found.lifted[int(bodies.origin[k])]
     view, scene = found.view, found.scene
@@ -74,7 +88,8 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     images = intrinsics.project(points)
     off = (images - tracks.points)[:, :n][tracks.seen[:, :n]]
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
-    cameras = (found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2]
+    if cameras is None:
+        cameras = (_turn(lifted, points, look) @ complete_rotation(lifted.cameras))[:, :2]
     turn = float(viewpoint_turn(cameras))
     facts = replace(
         lifted.diagnostics,
@@ -107,6 +122,21 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     if scene.any_focal:
         notes.append(lens_note(intrinsics, tracks.units))
     return replace(made, diagnostics=replace(made.diagnostics, notes=tuple(notes)))
+
+
+def _turn(lifted: Reconstruction, points: Tensor, look: Tensor) -> Tensor:
+    """Rotations (T, 3, 3) from the frame of what was lifted to the camera's, by which refinement turned the trunk.
+
+    Args:
+        lifted: along the lines of sight.
+        points: (T, N, 3) that it became in the camera's frame.
+        look: (T, 3, 3) from the camera's frame to the lines of sight; inverted where there is no trunk to go by.
+    """
+    if not has_trunk(lifted.skeleton):
+        return look.mT
+    frame = usual_posture(lifted.skeleton, points.dtype, points.device).frame
+    turn = frame(points) @ frame(lifted.points).mT
+    return torch.where(torch.linalg.det(turn)[:, None, None] > 0.5, turn, look.mT)
 
 
 def in_every_solution(result: Reconstruction, change: Callable[[Reconstruction], Reconstruction]) -> Reconstruction:
@@ -166,7 +196,7 @@ def _notes_on_solution(method: Method, found: Found, k: int, made: Reconstructio
     tracks, facts, before = made.tracks, made.diagnostics, found.lifted[0].diagnostics.doubt
     # True of what was lifted, perhaps not of this; straightened tracks do not leap where a film was cut.
     stale = [WHY_LOOSE, UNHELD, HARDLY, SINGLE, SEEMS_NEAR, BY_SHOTS, "weak perspective", "did not settle"]
-    if k:
+    if k or not found.flat:
         stale.append(SEE_OTHERS)
     notes = [
         note

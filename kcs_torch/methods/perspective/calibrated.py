@@ -123,7 +123,7 @@ def _reconstruct(
         best = with_feet(best, feet_on_ground(tracks, cameras))
     if searched:
         best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
-    return assemble(method, tracks, best)
+    return assemble(method, tracks, best, None if cameras is None else cameras.detach().clone())
 
 
 def _best_of_rounds(method: Method, tracks: Tracks, view: View, cameras: Tensor | None, usual: float | None) -> Found:

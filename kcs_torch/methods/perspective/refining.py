@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.inference import undifferentiated
 from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective.scene import STEPS, Bodies, Scene, ahead
@@ -71,14 +70,7 @@ def seen_along(view: View, lifted: Reconstruction, distance: Tensor, straight: T
     flat = view.along(clean_image(lifted)) * distance[:, None, None]
     middle = flat.mean(1, keepdim=True)
     points = torch.cat([middle + (flat - middle) / scales[:, None, None], lifted.points[..., 2:]], -1)
-    others = tuple(_turned(one, view.look) for one in lifted.alternatives)
-    lifted = replace(_turned(lifted, view.look), points=points, scales=scales)
-    return replace(lifted, tracks=straight, alternatives=others)
-
-
-def _turned(lifted: Reconstruction, look: Tensor) -> Reconstruction:
-    """A solution whose cameras are those of a frame turned by (T, 3, 3)."""
-    return replace(lifted, cameras=(look @ complete_rotation(lifted.cameras))[:, :2])
+    return replace(lifted, points=points, scales=scales, tracks=straight)
 
 
 @undifferentiated
@@ -151,9 +143,8 @@ def refine_again(found: Found, view: View, standing: Tensor | None, flips: bool)
     seen = found.lifted[0].tracks
     scene, bodies = _refined(scene, bodies.distance[0], bodies.depth, seen, flips, any_focal=True)
     bodies = replace(bodies, origin=origin[bodies.origin])
-    lifted = tuple(_turned(one, view.look @ found.view.look.mT) for one in found.lifted)
     through = focal if flips else before
-    return replace(found, bodies=bodies, lifted=lifted, scene=scene, view=view, through=through)
+    return replace(found, bodies=bodies, scene=scene, view=view, through=through)
 
 
 @undifferentiated

@@ -16,6 +16,7 @@ from kcs_torch.methods.perspective.along_rays import AlongRays
 from kcs_torch.methods.perspective.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.pkc.batch import serve
 from kcs_torch.methods.pkc.body import DAMPING, HOLD, Body
+from kcs_torch.methods.pkc.fixed_answer import uncertain_signs
 from kcs_torch.methods.pkc.flips import flipped, parts_of, promising
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
@@ -239,6 +240,13 @@ class Scene:
             held.append(fit_bones(some, goal, bones, stiffness=stiff, num_steps=HOLD, damping=DAMPING))
         body = torch.cat(held)
         return (body - body.mean(-2, keepdim=True)) * self.unit + middle
+
+    def uncertain(self, found: Bodies) -> list[str]:
+        """What is said of bones whose depth has another sign in a close rival of the best body."""
+        depth = found.depth / self.unit
+        points = torch.cat([self._image(found[:1])[None], depth[:1, ..., None]], -1)
+        lengths = median(bone_lengths(points, self.skeleton.bone_index(device=depth.device)), 1)
+        return uncertain_signs(Hypotheses(depth, lengths, found.energy), self.skeleton)
 
     def _image(self, best: Bodies) -> Tensor:
         """The image (T, N, 2) of a single body under parallel rays, in its unit."""

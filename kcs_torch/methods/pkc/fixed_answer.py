@@ -20,8 +20,9 @@ from kcs_torch.methods.pkc.answers import (
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct
 from kcs_torch.methods.pkc.moving_answer import STILL
+from kcs_torch.skeleton import Skeleton
 
-__all__ = ["SEE_OTHERS", "UNSIDED", "from_hypotheses"]
+__all__ = ["SEE_OTHERS", "UNSIDED", "from_hypotheses", "uncertain_signs"]
 
 SEE_OTHERS = "see the alternatives"
 """How notes end that are true of the best solution alone."""
@@ -35,6 +36,14 @@ UNSIDED = (
 
 OTHERS = 4
 """Further solutions that tell how sure depths are, whether they are returned or not."""
+
+
+def uncertain_signs(found: Hypotheses, skeleton: Skeleton) -> list[str]:
+    """What is said of bones whose depth has another sign in a close rival of the best hypothesis; nothing of none."""
+    doubtful = told_by_prior(found, skeleton)
+    if not doubtful:
+        return []
+    return [f"forward or backward is uncertain for {', '.join(doubtful)}, decided by usual postures: {SEE_OTHERS}"]
 
 
 def from_hypotheses(
@@ -65,10 +74,7 @@ def from_hypotheses(
     if other is not None:
         found = found.joined(other)
     found = distinct(found, max(alternatives, OTHERS) + 1, APART)
-    doubtful, decided = told_by_prior(found, body.skeleton), notes
-    if doubtful:
-        note = f"forward or backward is uncertain for {', '.join(doubtful)}, decided by usual postures"
-        decided = (*notes, f"{note}: {SEE_OTHERS}")
+    decided = (*notes, *uncertain_signs(found, body.skeleton))
     made = []
     wanted = found[: alternatives + 1]
     for k, (depth, points) in enumerate(zip(wanted.depth, body.bodies(wanted), strict=True)):
