@@ -12,7 +12,7 @@ from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
 from kcs_torch.methods.answer.root import standing_feet
 from kcs_torch.methods.pkc.body import Body
-from kcs_torch.methods.pkc.flips import flipped, parts_of
+from kcs_torch.methods.pkc.flips import FIRST, flipped, parts_of
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.strides import cheapest_runs, strides
@@ -97,6 +97,21 @@ def test_feet_tell_that_thighs_do_not_bounce() -> None:
     without = flipped(objective, parts, start)
     left = (without.depth - objective.joints(true)).square().mean((1, 2)).sqrt()
     assert left.min() > 0.5 * wrong
+
+
+def test_flips_of_legs_in_noise_cost_what_their_feet_do() -> None:
+    """The room that noise leaves counts on both sides, or feet would be looked at of no flip."""
+    objective, true, _ = thighs_that_bounce()
+    parts = parts_of(objective.skeleton, limbs_of(objective.skeleton, objective.posture.trunk.tolist()))
+    depth = objective.joints(true)[None]
+    lengths = bone_lengths(torch.cat([objective.image.expand(1, -1, -1, 2), depth[..., None]], -1), objective.bones)
+    lengths = lengths.median(1).values
+    best = Hypotheses(depth, lengths, objective(depth, lengths) + objective.ranking(depth, lengths))
+    flips = flipped(objective, parts, best)
+    flips = flips[flips.energy < best.energy + FIRST[0][0]]
+    feet = objective.contact(flips.depth) - objective.contact(depth)
+    assert len(feet) and bool((feet.abs() > 0.5).any())
+    assert_close(flips.energy, objective(flips.depth, flips.lengths) + objective.ranking(flips.depth, flips.lengths))
 
 
 def test_feet_that_never_stand_tell_nothing() -> None:

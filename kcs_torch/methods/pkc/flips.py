@@ -141,6 +141,7 @@ def flipped(
     member = members(parts, own)
     runs = flipped_runs(own, member, objective.weights.acceleration)
     energy = RunCosts(objective, body, best.lengths[0])(member, runs)
+    energy += objective.volume(best.depth, best.lengths)  # turning over changes no depth's size
 
     def depths(some: Tensor) -> Tensor:
         return body.turned(signs_of(runs.some(some), member, len(own))).depth
@@ -151,7 +152,6 @@ def flipped(
         near = (walks & (energy < best.energy + FIRST[0][0])).nonzero().flatten()
         for some in near.split(max(1, ROWS // len(own))):  # all of them would for long blocks take much memory
             energy[some] += objective.contact(depths(some))
-    energy += objective.volume(best.depth, best.lengths)  # turning over changes no depth's size
     order = energy.argsort()
     owner = runs.part[order].tolist()
     order = order[[k for k, part in enumerate(owner) if part not in owner[:k]]]
