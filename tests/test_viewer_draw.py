@@ -103,6 +103,17 @@ def test_several_people_are_drawn_together_and_one_by_one():
     assert names(draw_tracks(people, frame=0).axes[0]).keys() == {f"person {k}" for k in range(5)}
 
 
+def test_of_people_with_hands_one_has_names_and_fingers_have_numbers():
+    figure = draw_tracks([tracks(skeleton="wholebody63"), tracks(at=(900, 0), skeleton="wholebody63")])
+    together, alone = figure.axes
+    assert set(names(together)) == {"person 0", "person 1"}
+    said = set(names(alone))
+    body = SKELETONS["wholebody63"]
+    assert {f"{body.index(joint)} {joint}" for joint in ("left_shoulder", "right_knee")} | {"neck"} <= said
+    fingers = {j for j, joint in enumerate(body.joints) if "finger" in joint or "thumb" in joint}
+    assert {str(j) for j in fingers} <= said and overlaps(list(names(alone).values()), figure) <= 2
+
+
 def test_y_is_down_and_both_axes_have_one_scale():
     axis = draw_tracks(tracks()).axes[0]
     low, high = axis.get_ylim()

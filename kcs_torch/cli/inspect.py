@@ -128,7 +128,7 @@ def _spoken(facts: dict[str, Any]) -> str:
         f"{facts['path']}: format {facts['format']}, {counted(facts['frames'], 'frame')}, {rate}, "
         f"in {facts['units']}{image}",
         f"skeleton {facts['skeleton']}: {len(facts['joints'])} joints, {len(facts['bones'])} bones, {shape}",
-        f"joints: {', '.join(facts['joints'])}{virtual}",
+        f"joints: {', '.join(f'{k} {joint}' for k, joint in enumerate(facts['joints']))}{virtual}",
         "person  frames seen  mean confidence  joints unseen",
     ]
     rows = facts["people"]

@@ -32,14 +32,16 @@ LOOK = 100  # frames from the first in which anybody is seen, among which a clea
 CLEAR = 0.9  # share of the most joints seen in any of these frames, from which on a frame is clear
 NAMED = 3  # people drawn by themselves, with names
 SIDE = 8.0  # inches of a panel
-MANY = 45  # joints from which on a panel is larger and its letters are smaller
+MANY = 45  # joints from which on a panel is larger, one person has names, and crowded joints have their numbers alone
+CROWDED = 24.0  # points to the nearest joint below which one is crowded
 Array = NDArray[np.float64]
 
 
 def draw_tracks(people: Tracks | Sequence[Tracks], *, frame: int | None = None) -> Figure:
     """Draw one frame of tracks with the joints' numbers and names, so that a wrong order of joints is seen at once.
 
-    Of several people the first panel shows all, and one panel each the three of whom most is seen.
+    Of several people the first panel shows all, and one panel each the three of whom most is seen; where bodies have
+    hands, too, one panel the first of these. Joints without room for a name have their number alone.
 
     Args:
         people: tracks of the people of one clip.
@@ -63,9 +65,10 @@ def draw_tracks(people: Tracks | Sequence[Tracks], *, frame: int | None = None) 
     poses = [_pose(p, chosen) for p in people]
     counts = [int(np.isfinite(x[: p.skeleton.num_observed]).all(-1).sum()) for p, x in zip(people, poses, strict=True)]
     there = [k for k in range(len(people)) if counts[k]] or [0]
-    named = sorted(sorted(there, key=lambda k: -counts[k])[:NAMED])
+    most = max(p.num_joints for p in people)
+    named = sorted(sorted(there, key=lambda k: -counts[k])[: 1 if most > MANY else NAMED])
     panels: list[list[int]] = ([there] if len(people) > 1 else []) + [[k] for k in named]
-    figure, axes = _panels(len(panels), max(p.num_joints for p in people))
+    figure, axes = _panels(len(panels), most)
     head = f"{files_named(people)}: frame {chosen} of {frames} (the first is 0)"
     which = ", the first that is clear" if frame is None and chosen else ""
     _title(figure, f"{head}{which} · skeleton {people[0].skeleton.name}")
@@ -107,7 +110,7 @@ def draw_skeleton(skeleton: str | Path | Skeleton) -> Figure:
     _title(figure, f"{skeleton.name}: {', '.join(facts)}")
     places = flat_layout(skeleton)
     _fit_places(axis, places)
-    _body(axis, skeleton, places, named=True)
+    _body(axis, skeleton, places, named=True, whole=True)
     return figure
 
 
@@ -190,7 +193,8 @@ def _fit_places(axis: Any, places: Array) -> None:
     fit(axis, (low + high) / 2, (high - low) / 2, (0.68, 0.84))
 
 
-def _body(axis: Any, skeleton: Skeleton, places: Array, *, named: bool) -> None:
+def _body(axis: Any, skeleton: Skeleton, places: Array, *, named: bool, whole: bool = False) -> None:
+    """Draw a body; if it is ``named`` with its joints' names, of many crowded ones only where all are (``whole``)."""
     from matplotlib.collections import LineCollection
 
     bones, ends = bone_keys(skeleton), joint_keys(skeleton)
@@ -211,7 +215,19 @@ def _body(axis: Any, skeleton: Skeleton, places: Array, *, named: bool) -> None:
     )
     if named:
         names = [n if n == f"joint{j}" or hollow[j] else f"{j} {n}" for j, n in enumerate(skeleton.joints)]
-        write_labels(axis, places, names, list(hues), lines, size=7.0 if skeleton.num_joints > MANY else 10.5)
+        many = skeleton.num_joints > MANY
+        if many and not whole:
+            near = _crowded(axis, places)
+            names = [str(j) if near[j] and not hollow[j] else n for j, n in enumerate(names)]
+        write_labels(axis, places, names, list(hues), lines, size=7.0 if many and whole else 10.5)
+
+
+def _crowded(axis: Any, places: Array) -> Array:
+    """Which joints (N,) have no room for a name beside them."""
+    spots = axis.transData.transform(places) * 72 / axis.figure.dpi
+    gaps = np.linalg.norm(spots[:, None] - spots, axis=-1)
+    np.fill_diagonal(gaps, np.inf)
+    return np.asarray(np.nan_to_num(gaps, nan=np.inf).min(1) < CROWDED)
 
 
 def _tag(axis: Any, places: Array, words: str) -> None:

@@ -66,7 +66,7 @@ def write_labels(
         middle, cost = _candidates(pixels[i], half, outward[i], point)
         low, high = middle - half, middle + half
         cost = cost + 40 * (_overlap(low, high, taken[:, :2], taken[:, 2:]) > 0).sum(1)
-        cost = cost + 6 * _inside(low, high, pixels).sum(1) + 0.5 * _inside(low, high, drawn).sum(1)
+        cost = cost + 6 * _inside(low, high, pixels) + 0.5 * _inside(low, high, drawn)
         out = (low < [frame.x0, frame.y0]).any(1) | (high > [frame.x1, frame.y1]).any(1)
         best = int(np.argmin(cost + 100 * out))
         taken = np.concatenate([taken, np.concatenate([low[best], high[best]])[None]])
@@ -97,7 +97,9 @@ def _overlap(low: Array, high: Array, lows: Array, highs: Array) -> Array:
 
 
 def _inside(low: Array, high: Array, points: Array) -> Array:
-    return np.logical_and(points >= low[:, None], points <= high[:, None]).all(-1).astype(float)
+    """How many points lie in each of the boxes (C,)."""
+    x, y = points.T  # by coordinate, as arrays of pairs take ten times as long
+    return ((x >= low[:, :1]) & (x <= high[:, :1]) & (y >= low[:, 1:]) & (y <= high[:, 1:])).sum(1)
 
 
 def _plain(name: str) -> str:
