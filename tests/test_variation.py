@@ -117,6 +117,11 @@ def test_wherever_it_is_told_the_worst_bone_is():
     assert facts["loosest_bone"] == "Neck-UpperNeck"
     assert f"bone variation  {WORDS}\n" in describe(facts)
     assert "unknown: no bones" in describe(summary(walk_result()))
+    told = {**facts, "notes": ["tracks smoothed", "a focal length, a guess", "3 people found"]}
+    notes = [line for line in describe(told).splitlines() if "note:" in line]
+    assert [note.strip() for note in notes] == [
+        "note: a focal length, a guess", "note: tracks smoothed", "note: 3 people found"
+    ]  # fmt: skip
 
 
 def test_score_tells_the_worst_bone(tmp_path):

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 __all__ = ["answer", "describe", "one_line", "print_json", "progress", "summary", "unsaid"]
 
 
+OPEN = ("give ", "a guess", "uncertain")
+"""Words of notes that ask something of the user or doubt the answer: these come first."""
+
 _warned: list[str] = []
 """What the command that runs has warned of."""
 
@@ -186,4 +189,5 @@ def describe(facts: dict[str, Any], leave_out: Container[str] = ()) -> str:
         apart = f"{other['rms_difference']:.3g} {facts['units']} away (root mean square)"
         lines.append(f"  solution {other['solution']:<6} {value}{apart}: {other['differs']}")
     notes = [note for note in unsaid(facts["notes"], facts["source"]) if note not in leave_out]
+    notes.sort(key=lambda note: not any(words in note for words in OPEN))
     return "\n".join([*lines, *(f"  note: {one_line(note)}" for note in notes)])
