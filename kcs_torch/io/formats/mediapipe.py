@@ -1,4 +1,4 @@
-"""MediaPipe landmarks of poses and hands, which have no official file: JSON, CSV or NPY; x and y from 0 to 1."""
+"""MediaPipe landmarks of poses, hands and both, which have no official file: JSON, CSV or NPY; x and y from 0 to 1."""
 
 from __future__ import annotations
 

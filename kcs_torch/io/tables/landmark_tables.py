@@ -23,7 +23,7 @@ from kcs_torch.io.tables.long import LongHeader, read_long
 from kcs_torch.io.tables.wide import as_float, opened, read_wide
 from kcs_torch.skeleton import SKELETONS, Skeleton, guess_skeleton
 
-__all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "some_joints", "table_kind"]
+__all__ = ["ARRAYS", "frame_shape", "npy_shape", "read_csv", "read_npy", "some_joints", "table_kind"]
 
 _ROWS = {21: 21, 42: 21} | dict.fromkeys((33, 54, 75, 501, 511, 543, 553), 33)
 """How many landmarks a row of numbered ones may have, as of a hand or two, or of a pose with hands and a face behind
@@ -36,6 +36,8 @@ _FLAT |= {225: (75, 3), 258: (75, 4), 1662: (75, 4)}
 """Landmarks, and numbers of each, by how many numbers stand in a row."""
 _COUNTS = (33, 21, 42, 75, 543)
 """Landmarks of a pose, a hand, two hands, a pose and two hands, and of these with a face."""
+ARRAYS = "(frames, 33, 21, 42, 75 or 543, 2 to 5)"
+"""Shapes of arrays of landmarks, for messages."""
 _FEW = 0.1  # share of the landmarks that lie left of the image, or above it
 SOME = 10  # names of a body from which on a table is taken for one of it
 _LIMIT = 2**30  # bytes of a file
@@ -287,7 +289,7 @@ def read_npy(path: Path, body: Skeleton | None = None) -> Landmarks:
         layout = None if shape is None else frame_shape(shape)
         if shape is None or layout is None:
             got = "none of numbers" if shape is None else f"shape {shape}"
-            raise FormatError(f"{path}: expected (frames, {listed(_COUNTS, 9)} landmarks, 2 to 5 numbers), got {got}")
+            raise FormatError(f"{path}: expected an array {ARRAYS}, got {got}")
         if size > _LIMIT or math.prod(shape) > size:
             raise FormatError(f"{path}: expected an array of 1 GiB at most, as large as its file, got shape {shape}")
         array = np.load(path, allow_pickle=False).astype(np.float64)
