@@ -82,7 +82,7 @@ def table_kind(text: str) -> str:
     names = {_plain(name) for name in header.joints}
     named = len(_named() & names) >= SOME and (visible or bool(_own() & names))
     named = named or _person_with_hands(header.joints, []) is not None
-    numbered = len(names) in _ROWS and all(name.isdecimal() for name in names)
+    numbered = len(names) in _ROWS and all(map(_is_number, names))
     if numbered or (named and not (deep and not visible and _lengths(text, header))):
         return "landmarks"
     return "motion" if deep else "tracks"
@@ -113,7 +113,7 @@ def _long_kind(text: str, header: LongHeader) -> str:
                 places.append([as_float(cells[header.what[axis]]) for axis in ("x", "y", "z")[: 2 + header.deep]])
     except (csv.Error, ValueError, IndexError):  # what is wrong is told when it is read
         pass
-    numbers = {int(name) if name.isdecimal() else -1 for name in names}
+    numbers = {int(name) if _is_number(name) else -1 for name in names}
     numbered = numbers in [{*range(k, k + count)} for count in BODIES for k in (0, 1)]
     if numbered and not header.cells[header.joint].lower().startswith("landmark"):
         numbered = False
@@ -125,6 +125,10 @@ def _long_kind(text: str, header: LongHeader) -> str:
     within = are_shares(place) and bool((place[:, :2] < 0).mean() < _FEW)
     plain = {_plain(name) for name in names}
     return "landmarks" if within and len(_named() & plain) >= SOME and _own() & plain else "motion"
+
+
+def _is_number(name: str) -> bool:
+    return name.isdecimal() and len(name) < 5
 
 
 def _plain(name: str) -> str:
@@ -191,7 +195,7 @@ def _person_with_hands(joints: Mapping[str, dict[str, int]], notes: list[str]) -
     for part, count in _PARTS.items():
         names = SKELETONS[BODIES[count]].joints[:count]
         own = found.get(part, {})
-        if len(own) == count and all(name.isdecimal() for name in own):
+        if len(own) == count and all(map(_is_number, own)):
             marks += [own[name] for name in sorted(own, key=int)]
         elif not own or (len(own) >= SOME and own.keys() <= set(names) and own.keys() & _own()):
             marks += [own.get(name, {}) for name in names]
@@ -222,7 +226,7 @@ def some_joints(joints: Columns, body: Skeleton, notes: list[str]) -> Layout | N
 def _layout(joints: Columns, notes: list[str]) -> Layout:
     """The joints' names, and the columns of each; None where they are the usual ones, by number."""
     marks = {_plain(name): columns for name, columns in joints.items()}
-    if all(n.isdecimal() for n in marks):
+    if all(map(_is_number, marks)):
         marks = dict(sorted(marks.items(), key=lambda item: int(item[0])))
         count = _ROWS.get(len(marks), len(marks))
         if count < len(marks):
