@@ -371,6 +371,14 @@ def test_npy_of_two_hands(tmp_path, shape):
     assert {same(a, LEFT), same(b, LEFT)} == {same(a, RIGHT), same(b, RIGHT)} == {True, False}
 
 
+def test_csv_of_numbered_landmarks_with_hands(tmp_path):
+    (tmp_path / "a.csv").write_text(
+        table([f"{c}{k}" for k in range(75) for c in "xy"], ARRAYS["75 of 2"].reshape(4, -1))
+    )
+    (tracks,) = load_people(tmp_path / "a.csv", image_size=SIZE)
+    assert tracks.skeleton.joints[:69] == tuple(WHOLE_NAMES) and np.allclose(tracks.points[:, :69], WHOLE)
+
+
 @pytest.mark.parametrize("names", ["numbers", "names"])
 @pytest.mark.parametrize("visible", [True, False])
 def test_csv_of_a_person_with_hands(tmp_path, names, visible):

@@ -25,7 +25,7 @@ from kcs_torch.skeleton import SKELETONS, Skeleton, guess_skeleton
 
 __all__ = ["ARRAYS", "frame_shape", "npy_shape", "read_csv", "read_npy", "some_joints", "table_kind"]
 
-_ROWS = {21: 21, 42: 21} | dict.fromkeys((33, 54, 75, 501, 511, 543, 553), 33)
+_ROWS = {21: 21, 42: 21, 75: 75} | dict.fromkeys((33, 54, 501, 511, 543, 553), 33)
 """How many landmarks a row of numbered ones may have, as of a hand or two, or of a pose with hands and a face behind
 it, and how many of them are read."""
 _PREFIX = re.compile(r"\A(?:pose_?landmark|pose|landmark)[._]")
