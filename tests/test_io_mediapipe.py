@@ -320,6 +320,10 @@ def test_sides_of_a_mirror_are_those_of_the_wrists(tmp_path):
     ]
     (tracks,) = read(tmp_path, frames)
     assert same(tracks, WHOLE) and any("left and right hands are swapped" in n for n in tracks.notes)
+    frames[1]["handedness"][0] = frames[1]["handedness"][1]
+    (tracks,) = read(tmp_path, frames)
+    assert tracks.seen[:, :69].sum(1).tolist() == [69, 27, 69, 69]
+    assert any(n.startswith("hands of 1 frame are left out") for n in tracks.notes)
 
 
 def test_hands_of_nobody_in_particular_are_left_out(tmp_path):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, counted
 from kcs_torch.io.containers.jsonfile import as_frame_number, as_joints, as_text, entries, read_json
 from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.contents.shares import ASK, SIZE_HINT, are_shares
@@ -153,11 +153,16 @@ def put_together(
     if not any(poses.values()) or count == 21:
         out.frames = hands
         return
-    found = [[hand.track for hand in people] for people in hands.values()]
-    sides = [side for side in _SIDES if any(side in people for people in found)]
-    if any(len(people) > 1 for people in poses.values()) or any(len({*who} & {*sides}) < len(who) for who in found):
+    shown = sum(map(bool, hands.values()))
+    sided = lambda people: len({hand.track for hand in people} & {*_SIDES}) == len(people)  # noqa: E731
+    hands = {number: people if sided(people) else [] for number, people in hands.items()}
+    odd = shown - sum(map(bool, hands.values()))
+    if any(len(people) > 1 for people in poses.values()) or 2 * odd > shown:
         out.notes.append("the hands are left out: only those of one person are read, where the file tells their sides")
         return
+    if odd:
+        out.notes.append(f"hands of {counted(odd, 'frame')} are left out, as their sides are unknown, or the same")
+    sides = [side for side in _SIDES if any(hand.track == side for people in hands.values() for hand in people)]
     names = SKELETONS[BODIES[33]].joints[:33]
     wrists = [names.index(f"{side}_wrist") for side in _SIDES]
     if _swapped(poses, hands, wrists):
