@@ -58,7 +58,9 @@ def test_larger_bodies(tmp_path, count, name):
     body = SKELETONS[name]
     assert tracks.skeleton is body
     assert np.allclose(numbers(tracks, 23 if count == 133 else 26), found[:, : 23 if count == 133 else 26])
-    assert any("left out" in n for n in tracks.notes) == (count != 26)
+    told = {26: "", 68: "hands are left out", 133: "the face is left out", 136: "face and hands are left out"}[count]
+    assert any(n.startswith(told) and "left out" in n for n in tracks.notes) == (count != 26)
+    assert any("(--skeleton wholebody63) keeps the hands" in n for n in tracks.notes) == (count in (68, 136))
 
 
 def test_the_layouts_by_image(tmp_path):

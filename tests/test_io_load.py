@@ -1,6 +1,8 @@
 """Formats by content, the lists of formats, and choosing people."""
 
 import gzip
+import io
+import pickle
 import re
 import shutil
 import sys
@@ -82,14 +84,25 @@ def test_a_new_format_is_one_new_file(tmp_path, monkeypatch):
     assert set(writers) == set(WRITERS)
 
 
+def saved(array):
+    file = io.BytesIO()
+    np.save(file, array, allow_pickle=True)
+    return file.getvalue()
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("a.json", b"{", "got text that is not JSON"),
-        ("a.json", b'{"a": 1}', "got JSON with other content"),
+        ("a.json", b'{"a": 1}', "got JSON with other content .*pose_landmarks"),
         *[("a.json", nothing, "got JSON with nothing in it") for nothing in (b"{}", b"[]", b" \n")],
         ("a.json", b"[" * 100_000, "nested too deeply"),
         ("a.csv", b"x,y\n1,2\n", "a table that begins with 'x,y'"),
+        ("a.csv", b"1.5,2e-3\n1,2\n", "a table without names above its columns, that begins with '1.5,2e-3'"),
+        ("a.csv", b"a_x,a_y,a_z,b_x,b_y,b_z\n", "3D motion .*if z are depths of a detector's, leave these columns out"),
+        ("a.pkl", pickle.dumps([1]), "a pickle, .* json.dump"),
+        ("a.npy", saved(np.zeros((4, 17, 2))), r"a single array: .*savez.* \(frames, 33, 21, 42, 75 or 543, 2 to 5\)"),
+        ("a.npy", saved(np.array([{}])), "an array of Python objects, .* json.dump"),
         ("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(50), r"an HDF5 file that cannot be read \(damaged"),
         ("a.json.gz", gzip.compress(b"{}", mtime=0), "a compressed file: unpack it first, with gunzip"),
         ("a.csv", "a_x,a_y,b_x,b_y".encode("utf-16"), "text in UTF-16, .* save it in UTF-8"),

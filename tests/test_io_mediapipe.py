@@ -7,11 +7,12 @@ import pytest
 from samples import mediapipe_frames, person, write_json, write_mediapipe_csv, write_npy
 
 from kcs_torch.errors import FormatError, KcsError
-from kcs_torch.io import detect_format, load_people, load_tracks
+from kcs_torch.io import detect_format, load_motion, load_people, load_tracks
 from kcs_torch.skeleton import SKELETONS, Skeleton
 
 SIZE = (1000, 1000)
 NAMES = SKELETONS["mediapipe33"].joints[:33]
+HAND_NAMES = SKELETONS["hand21"].joints
 POSE, HAND = person(4, 33), person(4, 21)
 SEEN = 0.3 + 0.7 * 0.8  # the weight of the samples' visibility
 
@@ -131,6 +132,34 @@ def test_every_layout_of_json(tmp_path, name):
     assert tracks.weights.numpy() == pytest.approx(SEEN)
 
 
+def test_frames_that_are_bare_or_lines(tmp_path):
+    rows = [[[m["x"], m["y"], m["z"], m["visibility"]] for m in marks(p)] for p in POSE]
+    hands = [[[r[:3] for r in row[:21]], [r[:3] for r in row[-21:]]] for row in rows]
+    (tracks,) = read(tmp_path, {str(t): marks(p) for t, p in enumerate(POSE)})
+    assert same(tracks, POSE)
+    for frames in (rows, [[], None, *rows], [[row] for row in rows]):
+        (tracks,) = read(tmp_path, frames)
+        assert same(tracks.frames(tracks.num_frames - 4, tracks.num_frames), POSE)
+    assert len(read(tmp_path, hands)) == 2
+    lines = "\n".join(json.dumps({"frame": t, "pose_landmarks": marks(p)}) for t, p in enumerate(POSE))
+    (tmp_path / "a.jsonl").write_text(lines + "\n")
+    assert same(load_tracks(tmp_path / "a.jsonl", image_size=SIZE), POSE)
+    (tmp_path / "a.jsonl").write_text(lines[:-9])
+    with pytest.raises(FormatError, match="does not parse: line 4: "):
+        load_tracks(tmp_path / "a.jsonl", image_size=SIZE)
+
+
+def test_hands_that_say_their_side_each(tmp_path):
+    other = person(4, 21, at=(230.0, 320.0))
+    frames = [
+        {"hands": [{"handedness": s, "landmarks": marks(h, False)} for s, h in (("Left", a), ("Right", b))]}
+        for a, b in zip(HAND, other, strict=True)
+    ]
+    a, b = read(tmp_path, frames)
+    assert {same(a, HAND), same(b, HAND)} == {same(a, other), same(b, other)} == {True, False}
+    assert {a.notes[0], b.notes[0]} == {f"the file calls this one '{side}'" for side in ("left", "right")}
+
+
 def test_frames_by_number(tmp_path):
     frames = {"3": {"pose_landmarks": marks(POSE[0])}, "10": {"pose_landmarks": marks(POSE[1])}}
     (tracks,) = read(tmp_path, {**frames, "5": {"pose_landmarks": None}})
@@ -184,15 +213,10 @@ def test_several_people_are_followed(tmp_path):
     assert same(a, POSE) and same(b, far)
 
 
-def test_hands_are_left_out_beside_a_pose_and_read_alone(tmp_path):
-    frames = [{"pose_landmarks": marks(p), "right_hand_landmarks": marks(h)} for p, h in zip(POSE, HAND, strict=True)]
-    (pose,) = read(tmp_path, frames)
-    assert same(pose, POSE)
-    assert "the hands are left out: only the pose is read" in pose.notes
+def test_hands_without_a_pose(tmp_path):
     left = person(4, 21, at=(800.0, 500.0))
-    for frame, hand in zip(frames, left, strict=True):
-        del frame["pose_landmarks"]
-        frame["left_hand_landmarks"] = marks(hand * [1, 1, 0])
+    pairs = zip(left, HAND, strict=True)
+    frames = [{"left_hand_landmarks": marks(a * [1, 1, 0]), "right_hand_landmarks": marks(b)} for a, b in pairs]
     hands = read(tmp_path, frames)
     assert {h.skeleton.name for h in hands} == {"hand21"}
     assert any(same(h, HAND) for h in hands) and any(same(h, left) for h in hands)
@@ -217,6 +241,195 @@ def test_handedness_tells_hands_apart(tmp_path):
     a, b = read(tmp_path, frames)
     assert {same(a, HAND), same(b, HAND)} == {same(a, other), same(b, other)} == {True, False}
     assert any("track ids" in n for n in a.notes)
+
+
+# ---------------------------------------------------------------------- a person with hands
+
+GUESSES = [f"{side}_{finger}" for side in ("left", "right") for finger in ("pinky", "index", "thumb")]
+KEPT = [k for k, name in enumerate(NAMES) if name not in GUESSES]
+LEFT, RIGHT = (HAND[..., :2] * [sign, 1] for sign in (-1, 1))
+LEFT, RIGHT = (h - h[:, :1] + POSE[:, w, None, :2] for h, w in ((LEFT, 15), (RIGHT, 16)))
+FACE = POSE[:, :1, :2] + np.random.default_rng(0).uniform(-5, 5, (1, 468, 2))
+WHOLE = np.concatenate([POSE[:, KEPT, :2], LEFT, RIGHT], 1)
+WHOLE_NAMES = [
+    *(NAMES[k] for k in KEPT),
+    *(f"{side}_hand_{joint}" for side in ("left", "right") for joint in HAND_NAMES),
+]
+
+
+def wide(points, *more):
+    """Shares of the image, with further numbers of each landmark."""
+    rest = [np.broadcast_to(m, points.shape[:2])[..., None] for m in more]
+    return np.concatenate([points[..., :2] / 1000, *rest], -1)
+
+
+def with_hands(key="{}_landmarks", inside=lambda m: m):
+    both = zip(POSE, LEFT, RIGHT, strict=True)
+    return [
+        {
+            key.format("pose"): inside(marks(p)),
+            key.format("left_hand"): inside(marks(np.insert(a, 2, 0, -1))),
+            key.format("right_hand"): inside(marks(np.insert(b, 2, 0, -1), False)),
+        }
+        for p, a, b in both
+    ]
+
+
+def test_a_pose_and_its_hands_are_one_person(tmp_path):
+    """The hands were left out."""
+    camel = [{f"{k.split('_')[0]}{'Hand' * ('hand' in k)}Landmarks": v for k, v in f.items()} for f in with_hands()]
+    for frames in (
+        with_hands(),
+        with_hands("{}"),
+        camel,
+        with_hands(inside=lambda m: {"landmark": m}),
+        with_hands("{}", lambda m: [[p["x"], p["y"], 0.1, *filter(None, [p.get("visibility")])] for p in m]),
+    ):
+        (tracks,) = read(tmp_path, frames)
+        assert tracks.skeleton.joints[:69] == tuple(WHOLE_NAMES) and same(tracks, WHOLE)
+        assert {"left_wrist-left_hand_wrist", "right_hand_ring_finger_dip-right_hand_ring_finger_tip"} < {
+            *tracks.skeleton.bone_names
+        }
+        assert tracks.weights[:, :27].numpy() == pytest.approx(SEEN) and (tracks.weights[:, 27:69] == 1).all()
+        assert any("guesses left_pinky, left_index, left_thumb, right_pinky" in n for n in tracks.notes)
+        (pose,) = read(tmp_path, frames, skeleton="mediapipe33")
+        assert pose.skeleton.name == "mediapipe33" and same(pose, POSE)
+        hands = read(tmp_path, frames, skeleton="hand21")
+        assert len(hands) == 2 and any(same(h, LEFT) for h in hands)
+
+
+def test_a_hand_may_be_unseen_or_not_there(tmp_path):
+    frames = with_hands()
+    for frame in frames:
+        del frame["left_hand_landmarks"]
+        frame["face_landmarks"] = marks(np.insert(FACE[0], 2, 0, -1))
+    frames[1]["right_hand_landmarks"] = None
+    frames[2]["pose_landmarks"] = []
+    (tracks,) = read(tmp_path, frames)
+    own = [name for name in NAMES if name not in GUESSES[3:]]
+    assert list(tracks.skeleton.joints[:51]) == own + WHOLE_NAMES[-21:]
+    assert tracks.seen[:, :51].sum(1).tolist() == [51, 30, 21, 51]
+    assert "the face is left out" in tracks.notes
+
+
+def test_sides_of_a_mirror_are_those_of_the_wrists(tmp_path):
+    frames = [
+        {"pose_landmarks": [pose], "hand_landmarks": [a, b], "handedness": [[{"category_name": s}] for s in sides]}
+        for sides in [("Right", "Left")]
+        for pose, a, b in (f.values() for f in with_hands())
+    ]
+    (tracks,) = read(tmp_path, frames)
+    assert same(tracks, WHOLE) and any("left and right hands are swapped" in n for n in tracks.notes)
+    frames[1]["handedness"][0] = frames[1]["handedness"][1]
+    (tracks,) = read(tmp_path, frames)
+    assert tracks.seen[:, :69].sum(1).tolist() == [69, 27, 69, 69]
+    assert any(n.startswith("hands of 1 frame are left out") for n in tracks.notes)
+
+
+def test_hands_of_nobody_in_particular_are_left_out(tmp_path):
+    frames = with_hands()
+    unsided = [{"pose_landmarks": p, "hand_landmarks": [a, b]} for p, a, b in (f.values() for f in frames)]
+    several = [{**frame, "pose_landmarks": [frame["pose_landmarks"]] * 2} for frame in frames]
+    for other in (unsided, several):
+        tracks = read(tmp_path, other)[0]
+        assert same(tracks, POSE) and any("the hands are left out: only those of one" in n for n in tracks.notes)
+
+
+FLAT = [wide(POSE, 0.1, 0.8).reshape(4, -1), *(wide(h, 0.1).reshape(4, -1) for h in (LEFT, RIGHT))]
+ARRAYS = {
+    "1662": np.concatenate([FLAT[0], wide(FACE, 0.1).reshape(4, -1), *FLAT[1:]], 1),
+    "258": np.concatenate(FLAT, 1),
+    "543, face first": np.concatenate([wide(h, -0.1) for h in (FACE, LEFT, POSE, RIGHT)], 1),
+    "543, pose first": np.concatenate([wide(h, -0.1) for h in (POSE, FACE, LEFT, RIGHT)], 1),
+    "543, without z": np.concatenate([wide(h) for h in (FACE, LEFT, POSE, RIGHT)], 1),
+    "75 of 2": np.concatenate([wide(h) for h in (POSE, LEFT, RIGHT)], 1),
+    "75 of 4": np.concatenate([wide(h, 0.1, v) for h, v in ((POSE, 0.8), (LEFT, 0), (RIGHT, 0))], 1),
+    "225": np.concatenate([wide(h, -0.1) for h in (POSE, LEFT, RIGHT)], 1).reshape(4, -1),
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_npy_of_a_person_with_hands(tmp_path, name):
+    array = ARRAYS[name]
+    path = write_npy(tmp_path / "a.npy", array)
+    (tracks,) = load_people(path, image_size=SIZE)
+    assert tracks.skeleton.joints[:69] == tuple(WHOLE_NAMES) and np.allclose(tracks.points[:, :69], WHOLE)
+    seen = SEEN if name in ("1662", "258", "75 of 4") else 1
+    assert tracks.weights[:, :27].numpy() == pytest.approx(seen) and (tracks.weights[:, 27:69] == 1).all()
+    assert ("the face is left out" in tracks.notes) == (name[:4] in ("1662", "543,"))
+    assert same(load_tracks(path, image_size=SIZE, skeleton="mediapipe33"), POSE)
+
+
+def test_npy_of_hands_that_are_not_there(tmp_path):
+    array = ARRAYS["1662"].copy()
+    array[:, -63:], array[1, -126:-63] = 0, 0
+    (tracks,) = load_people(write_npy(tmp_path / "a.npy", array), image_size=SIZE)
+    assert tracks.seen[:, :51].sum(1).tolist() == [51, 30, 51, 51]
+    assert {*GUESSES[3:]} < {*tracks.skeleton.joints} and not {*GUESSES[:3]} & {*tracks.skeleton.joints}
+
+
+@pytest.mark.parametrize("shape", [(4, 2, 21, 3), (4, 42, 3), (4, 126)])
+def test_npy_of_two_hands(tmp_path, shape):
+    array = np.concatenate([wide(LEFT, 0.2), wide(RIGHT, 0.2)], 1)
+    a, b = load_people(write_npy(tmp_path / "a.npy", array.reshape(shape)), image_size=SIZE)
+    assert {same(a, LEFT), same(b, LEFT)} == {same(a, RIGHT), same(b, RIGHT)} == {True, False}
+
+
+def test_csv_of_numbered_landmarks_with_hands(tmp_path):
+    (tmp_path / "a.csv").write_text(
+        table([f"{c}{k}" for k in range(75) for c in "xy"], ARRAYS["75 of 2"].reshape(4, -1))
+    )
+    (tracks,) = load_people(tmp_path / "a.csv", image_size=SIZE)
+    assert tracks.skeleton.joints[:69] == tuple(WHOLE_NAMES) and np.allclose(tracks.points[:, :69], WHOLE)
+
+
+@pytest.mark.parametrize("names", ["numbers", "names"])
+@pytest.mark.parametrize("visible", [True, False])
+def test_csv_of_a_person_with_hands(tmp_path, names, visible):
+    """Without visibilities it was called 3D motion."""
+    parts = {"pose": (POSE, NAMES), "left_hand": (LEFT, HAND_NAMES), "right_hand": (RIGHT, HAND_NAMES)}
+    head, columns = ["frame"], [np.arange(4)[:, None]]
+    for part, (points, own) in parts.items():
+        third = "xyzv" if visible and part == "pose" else "xyz"
+        head += [f"{part}_{k if names == 'numbers' else name}_{c}" for k, name in enumerate(own) for c in third]
+        columns.append(wide(points, 0.1, 0.8)[..., : len(third)].reshape(4, -1))
+    (tmp_path / "a.csv").write_text(table(head, np.concatenate(columns, 1).tolist()))
+    assert detect_format(tmp_path / "a.csv") == "mediapipe"
+    with pytest.raises(FormatError, match="give image_size"):
+        load_tracks(tmp_path / "a.csv")
+    (tracks,) = load_people(tmp_path / "a.csv", image_size=SIZE)
+    assert tracks.skeleton.joints[:69] == tuple(WHOLE_NAMES) and np.allclose(tracks.points[:, :69], WHOLE)
+    assert tracks.weights[:, :27].numpy() == pytest.approx(SEEN if visible else 1)
+
+
+def test_hands_on_another_body_are_no_landmarks(tmp_path):
+    names = [*SKELETONS["coco17"].joints[:17], *(f"left_hand_{joint}" for joint in HAND_NAMES)]
+    rows = person(4, 38)[..., :2].reshape(4, -1).tolist()
+    (tmp_path / "a.csv").write_text(table([f"{name}_{c}" for name in names for c in "xy"], rows))
+    assert detect_format(tmp_path / "a.csv") == "csv"
+    assert list(load_tracks(tmp_path / "a.csv").skeleton.joints[:38]) == names
+
+
+def long_table(parts):
+    return [
+        [t, *([f"{t}-{part}-{k}", part] if len(parts) > 1 else []), k, x / 1000, y / 1000, -0.1]
+        for t in range(4)
+        for part, points in parts.items()
+        for k, (x, y) in enumerate(points[t, :, :2].tolist())
+    ]
+
+
+def test_long_csv_of_a_person_with_hands(tmp_path):
+    """A table of a well-known contest."""
+    head = ["frame", "row_id", "type", "landmark_index", "x", "y", "z"]
+    rows = long_table({"face": FACE, "left_hand": LEFT, "pose": POSE, "right_hand": RIGHT})
+    (tmp_path / "a.csv").write_text(table(head, rows))
+    assert detect_format(tmp_path / "a.csv") == "mediapipe"
+    (tracks,) = load_people(tmp_path / "a.csv", image_size=SIZE)
+    assert tracks.skeleton.joints[:69] == tuple(WHOLE_NAMES) and np.allclose(tracks.points[:, :69], WHOLE)
+    assert "the face is left out" in tracks.notes
+    (tmp_path / "a.csv").write_text(table(head, [row for row in rows if "hand" in row[2]]))
+    assert len(load_people(tmp_path / "a.csv", image_size=SIZE)) == 2
 
 
 # ---------------------------------------------------------------------- tables
@@ -271,6 +484,24 @@ def test_numbered_joints_of_other_detectors_are_no_landmarks(tmp_path, count, ki
 
 def table(columns, rows):
     return "\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)])
+
+
+@pytest.mark.parametrize(
+    ("joint", "names"), [("landmark", range(33)), ("landmark_index", range(1, 34)), ("name", NAMES)]
+)
+def test_long_csv_with_depths(tmp_path, joint, names):
+    """They were called 3D motion."""
+    names = list(names)
+    rows = [[row[0], names[row[1]], *row[2:]] for row in long_table({"pose": POSE})]
+    (tmp_path / "a.csv").write_text(table(["frame", joint, "x", "y", "z"], rows))
+    assert detect_format(tmp_path / "a.csv") == "mediapipe"
+    tracks = load_tracks(tmp_path / "a.csv", image_size=SIZE)
+    assert tracks.skeleton.name == "mediapipe33" and same(tracks, POSE)
+    assert load_motion(tmp_path / "a.csv", format="csv").num_frames == 4
+    metres = [[*row[:2], 3 * (row[2] - 0.25), 3 * (row[3] - 0.35), row[4]] for row in rows]
+    (tmp_path / "a.csv").write_text(table(["frame", "joint", "x", "y", "z"], metres))
+    with pytest.raises(FormatError, match=r"3D motion \(csv\)"):
+        load_tracks(tmp_path / "a.csv", image_size=SIZE)
 
 
 def test_csv_of_some_landmarks(tmp_path):
@@ -350,7 +581,7 @@ def test_blank_cells_are_unseen(tmp_path):
         (POSE[:, :, [0, 1, 2, 2]].reshape(4, 132), None),
         (POSE[:, :, :2], None),
         (POSE.reshape(4, 99), "third number of each landmark"),
-        (np.concatenate([POSE[:, :, [0, 1, 2, 2]].reshape(4, 132), np.ones((4, 1530))], 1), "the first 132 are read"),
+        (np.concatenate([POSE[:, :, [0, 1, 2, 2]].reshape(4, 132), np.zeros((4, 1530))], 1), "the face is left out"),
     ],
     ids=["4", "flat", "2", "3", "holistic"],
 )
@@ -369,7 +600,9 @@ def test_npy_of_depths_and_of_hands(tmp_path):
     deep = POSE.copy()
     deep[..., 2] = np.linspace(-0.5, 0.5, 33)
     assert (load_tracks(write_npy(tmp_path / "a.npy", deep)).weights == 1).all()
-    assert same(load_tracks(write_npy(tmp_path / "a.npy", HAND[..., :2])), HAND)
+    for hand in (HAND[..., :2], HAND, HAND.reshape(4, 63)):  # a hand has no visibilities: the third is z
+        tracks = load_tracks(write_npy(tmp_path / "a.npy", hand))
+        assert same(tracks, HAND) and (tracks.weights == 1).all()
     blank = POSE.copy()
     blank[1] = np.nan
     assert load_tracks(write_npy(tmp_path / "a.npy", blank)).seen.any(1).tolist() == [True, False, True, True]
@@ -451,12 +684,12 @@ def test_npy_that_is_none_is_told(tmp_path):
             load_people(path, format="mediapipe", image_size=SIZE)
         return path.read_bytes()
 
-    told(np.zeros((4, 17, 2)), r"\(frames, 33 or 21, 2 to 5\), got shape \(4, 17, 2\)")
+    told(np.zeros((4, 17, 2)), r"\(frames, 33, 21, 42, 75 or 543, 2 to 5\), got shape \(4, 17, 2\)")
     told(np.array([{"a": 1}], object), "got none of numbers", allow_pickle=True)
     told(np.full((4, 33, 2), 1e12), "numbers beyond")
     told(np.full((4, 33, 2), np.inf), "numbers beyond")
     told(np.full((4, 33, 2), np.nan), "landmarks in at least one of 4 frames")
-    good = told(np.zeros((4, 33, 2)), "expected people in at least one")
+    good = told(np.zeros((4, 33, 2)), "landmarks in at least one of 4 frames")
     (tmp_path / "cut.npy").write_bytes(good[:-9])
     with pytest.raises(FormatError, match=r"cut\.npy: is damaged or truncated"):
         load_people(tmp_path / "cut.npy", image_size=SIZE)

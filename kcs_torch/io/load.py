@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -15,6 +16,7 @@ from kcs_torch.io.containers.hdf5 import read_tree
 from kcs_torch.io.contents.shares import ASK
 from kcs_torch.io.motion import MOTION_READERS
 from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, discover, only_format
+from kcs_torch.io.tables.landmark_tables import ARRAYS
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
@@ -213,9 +215,10 @@ def describe(probe: Probe) -> str:
     """What a path that no reader recognises holds, in a few words."""
     motion = [reader.name for reader in MOTION_READERS.values() if reader.recognises(probe)]
     if motion:
+        depths = "; if z are depths of a detector's, leave these columns out" if motion[0] == "csv" else ""
         return (
             f"3D motion ({motion[0]}): `kcs-torch convert`, `angles` and `score` take it; in Python "
-            "load_motion(path) reads it, and its .tracks() makes 2D tracks"
+            f"load_motion(path) reads it, and its .tracks() makes 2D tracks{depths}"
         )
     if probe.files:
         suffixes = sorted({f.suffix or f.name for f in probe.files})
@@ -234,7 +237,10 @@ def describe(probe: Probe) -> str:
             return "JSON that is nested too deeply"
         except (OSError, ValueError) as error:
             return f"text that is not JSON ({error})"
-        return "JSON with other content" if held else "JSON with nothing in it"
+        landmarks = '[{"pose_landmarks": [{"x": .5, "y": .5, "visibility": 1}, ...]}, ...], a frame each'
+        return (
+            f"JSON with other content (landmarks of MediaPipe's are {landmarks})" if held else "JSON with nothing in it"
+        )
     if looks_like_video(probe.head):
         return "a video: find the joints in it first, with `kcs-torch detect VIDEO -o tracks.npz`"
     if probe.head.startswith(b"\x89HDF"):
@@ -243,17 +249,25 @@ def describe(probe: Probe) -> str:
         except FormatError as error:
             return f"an HDF5 file that cannot be read ({str(error).removeprefix(f'{probe.path}: ')})"
         return f"an HDF5 file with other content ({listed(held, 8) or 'nothing'})"
-    if probe.head.startswith((b"PK\x03\x04", b"\x80")):
+    if probe.head.startswith(b"\x80"):
+        return "a pickle, which may hold code: write what it holds with json.dump, or arrays with numpy.savez"
+    if probe.head.startswith(b"PK\x03\x04"):
         return "a binary file with other content"
     if probe.head.startswith(b"\x1f\x8b"):
         return "a compressed file: unpack it first, with gunzip"
     if probe.head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "text in UTF-16, which some spreadsheets write: save it in UTF-8"
     if probe.head.startswith(b"\x93NUMPY"):
-        return "a single array: write it with numpy.savez(path, points2d=array), (frames, joints, 2), NaN where unseen"
+        if b"'|O'" in probe.head[:256]:
+            return "an array of Python objects, which may hold code: write what it holds with json.dump"
+        return (
+            "a single array: write it with numpy.savez(path, points2d=array), (frames, joints, 2), NaN where unseen "
+            f"(of MediaPipe's landmarks: {ARRAYS})"
+        )
     if probe.suffix in (".csv", ".tsv"):
         line = probe.head.split(b"\n", 1)[0].decode("utf-8", "replace").strip("\ufeff\r")
         wanted = "csv has a row a frame and columns name_x, name_y of each joint, or columns frame, joint, x, y"
-        return f"a table that begins with {brief(line)!r}: {wanted}"
+        bare = "without names above its columns, " if re.fullmatch(r"[-+0-9.eE,;\t ]+", line) else ""
+        return f"a table {bare}that begins with {brief(line)!r}: {wanted}"
     start = probe.head[:16]
     return f"a file that begins with {start.decode()!r}" if start.isascii() else f"a file that begins with {start!r}"

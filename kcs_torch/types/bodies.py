@@ -194,8 +194,9 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
     ordered = numbered(names) and found == list(range(len(names)))
     missing = [n for n, i in zip(wanted, found, strict=True) if i is None or ordered]
     if not missing:
-        spare = len(names) - len(wanted)
-        notes.append(f"joints matched by name with skeleton '{body.name}'" + (f"; {spare} left out" if spare else ""))
+        spare = [name for i, name in enumerate(names) if i not in found]
+        told = f"; {len(spare)} left out: {listed(spare, 4)}" if spare else ""
+        notes.append(f"joints matched by name with skeleton '{body.name}'{told}")
         return [i for i in found if i is not None]
     if len(names) == len(wanted) and all(i in (None, j) for j, i in enumerate(found)):
         pairs = [f"{names[wanted.index(n)]} for {n}" for n in missing]
@@ -207,9 +208,9 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
             f"joints matched by name with skeleton '{body.name}'; not among them, so unseen: {', '.join(missing)}"
         )
         return [-1 if i is None else i for i in found]
-    listed = ", ".join(names)
+    there = ", ".join(names)
     raise SkeletonError(
         f"{source}: expected the {len(wanted)} joints of skeleton '{body.name}', got {len(names)} joints, none of them "
-        f"named {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''}; they are {listed[:1000]}"
-        + (" ..." if len(listed) > 1000 else "")
+        f"named {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''}; they are {there[:1000]}"
+        + (" ..." if len(there) > 1000 else "")
     )

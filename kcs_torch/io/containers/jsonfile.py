@@ -80,8 +80,12 @@ def outline(head: bytes) -> frozenset[Route]:
     return frozenset(found)
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, *, lines: bool = False) -> Any:
     """Read a JSON file.
+
+    Args:
+        path: the file.
+        lines: whether one with a value on each line is read, too, as their list.
 
     Raises:
         FormatError: it cannot be read, is larger than 1 GiB, or is no JSON.
@@ -90,7 +94,10 @@ def read_json(path: Path) -> Any:
         size = path.stat().st_size
         if size > LIMIT:
             raise FormatError(f"{path}: expected 1 GiB of JSON at most, got {size} bytes: split the file")
-        return json.loads(path.read_bytes())
+        text = path.read_bytes()
+        if lines and len(first := text.split(b"\n", 1)) > 1 and first[1].strip() and _is_json(first[0]):
+            return [_value(line, i) for i, line in enumerate(text.split(b"\n"), 1) if line.strip()]
+        return json.loads(text)
     except OSError as error:
         raise read_error(path, error) from None
     except FormatError:
@@ -101,6 +108,23 @@ def read_json(path: Path) -> Any:
         raise FormatError(f"{path}: does not fit into memory: split the file") from None
     except ValueError as error:  # also of bytes that are no text
         raise FormatError(f"{path}: expected JSON, got text that does not parse: {error}") from None
+
+
+def _is_json(line: bytes) -> bool:
+    """Whether a line is a JSON value by itself."""
+    try:
+        json.loads(line)
+    except ValueError:
+        return False
+    return True
+
+
+def _value(line: bytes, number: int) -> Any:
+    """The value of a line; an error that names the line if it is none."""
+    try:
+        return json.loads(line)
+    except ValueError as error:
+        raise ValueError(f"line {number}: {error}") from None
 
 
 def entries(value: Any, where: str) -> Iterator[tuple[str, dict[str, Any]]]:

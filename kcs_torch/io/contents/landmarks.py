@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, counted
 from kcs_torch.io.containers.jsonfile import as_frame_number, as_joints, as_text, entries, read_json
 from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.contents.shares import ASK, SIZE_HINT, are_shares
 from kcs_torch.io.contents.times import frames_of_times, rate_of_times, time_unit
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import Options
-from kcs_torch.skeleton import SKELETONS
+from kcs_torch.skeleton import SKELETONS, Skeleton
 from kcs_torch.types.image_size import told_image_size
 from kcs_torch.types.intake import FARTHEST
 from kcs_torch.types.size import METRES, short_unit
@@ -26,28 +27,38 @@ from kcs_torch.types.size import METRES, short_unit
 __all__ = [
     "BODIES",
     "CONFIDENCES",
+    "FACE_LEFT_OUT",
     "FRAME_KEYS",
     "KEYS",
+    "SHORT_KEYS",
     "VISIBILITIES",
     "VISIBLE",
     "Landmarks",
     "by_visibility",
+    "nested_landmarks",
+    "put_together",
     "read_landmarks_json",
     "settle",
 ]
 
 BODIES = {33: "mediapipe33", 21: "hand21"}
-_POSE = ("pose_landmarks", "poseLandmarks", "landmarks", "landmark", "keypoints")
+_POSE = ("pose_landmarks", "poseLandmarks", "pose", "landmarks", "landmark", "keypoints")
 _HANDS = ("hand_landmarks", "handLandmarks", "multi_hand_landmarks", "multiHandLandmarks")
+_SIDES = ("left", "right")
 _ONE_HAND = {
-    "left_hand_landmarks": "left",
-    "leftHandLandmarks": "left",
-    "right_hand_landmarks": "right",
-    "rightHandLandmarks": "right",
+    key: side
+    for side in _SIDES
+    for key in (f"{side}_hand_landmarks", f"{side}HandLandmarks", f"{side}_hand", f"{side}Hand")
 }
-KEYS = frozenset([*_POSE[:2], *_HANDS, *_ONE_HAND])
+_FACE = ("face_landmarks", "faceLandmarks", "face")
+KEYS = frozenset([*_POSE[:2], *_HANDS, *(key for key in _ONE_HAND if key.lower().endswith("landmarks"))])
 """Keys that only MediaPipe's results have."""
+SHORT_KEYS = frozenset([_POSE[2], *_ONE_HAND, "hands", *_FACE]) - KEYS
+"""Keys of other files, too, where nothing like landmarks stands below them."""
+_GUESSES = ("pinky", "index", "thumb")
+"""What a pose guesses of each hand."""
 _UNLIKE = 0.25  # share by which a rate that is told and that of the times differ if they are of other frames
+_SAID = ("handedness", "label", "side", "hand", "type")  # what a hand's side is called
 _LISTS = ("frames", "results", "data", "detections")
 FRAME_KEYS = ("frame", "frame_id", "frame_number", "frame_idx", "frame_index", "index")
 CONFIDENCES = ("confidence", "conf", "score", "likelihood", "probability", "prob", "c")
@@ -64,6 +75,17 @@ VISIBLE = (
     f"{1 - _HIDDEN:g} v"
 )
 """What to say of confidences that are made of visibilities."""
+
+FACE_LEFT_OUT = "the face is left out"
+"""What to say of the landmarks of a face."""
+
+_NESTED = re.compile(rb"\[(?:(?:null|\[\]),)*\[{1,2}((?:\[[^\[\]{}]*\],?)+)\]")
+
+
+def nested_landmarks(head: bytes) -> bool:
+    """Whether JSON begins with lists of numbers of which a frame, or a person of it, has 33 or 21."""
+    first = _NESTED.match(head.translate(None, b" \t\r\n"))
+    return first is not None and first[1].count(b"[") in BODIES
 
 
 @dataclass
@@ -87,9 +109,9 @@ class Landmarks:
         return unit if unit in METRES else "px"
 
 
-def read_landmarks_json(path: Path) -> Landmarks:
-    """Read a list of frames, or an object that holds one; poses where there are any, hands otherwise."""
-    data = read_json(path)
+def read_landmarks_json(path: Path, body: Skeleton | None = None) -> Landmarks:
+    """Read a list of frames, an object that holds one, or a frame a line; as :func:`put_together`."""
+    data = read_json(path, lines=True)
     out = Landmarks()
     if isinstance(data, dict):
         sizes = [data.get("image_size"), *([data.get(k + s) for s in ("width", "height")] for k in ("", "image_"))]
@@ -102,12 +124,78 @@ def read_landmarks_json(path: Path) -> Landmarks:
         if number in poses:
             raise FormatError(f"{where}: expected every frame once, got frame {number} again")
         poses[number], hands[number] = _people(frame, where, out.seen)
-    out.frames = poses
-    if not any(poses.values()) and any(hands.values()):
-        out.frames = hands
-    elif any(hands.values()):
-        out.notes.append("the hands are left out: only the pose is read")
+    if any(isinstance(frame, dict) and any(map(frame.get, _FACE)) for _, frame, _ in listed):
+        out.notes.append(FACE_LEFT_OUT)
+    put_together(out, poses, hands, body)
     return out
+
+
+def put_together(
+    out: Landmarks,
+    poses: dict[int, list[Sighting]],
+    hands: dict[int, list[Sighting]],
+    body: Skeleton | None = None,
+) -> None:
+    """Give each frame its people: poses where there are any, with the hands of one person; hands otherwise.
+
+    One person's hands are told by their sides, at most one of each in a frame. A hand has no visibilities.
+
+    Args:
+        out: gets frames and, of a person with hands, names.
+        poses: (33, 3) of each frame.
+        hands: (21, 3) of each frame, by whatever is known of their side.
+        body: the caller's skeleton: of 33 joints it takes poses alone, of 21 hands.
+    """
+    count = 0 if body is None else body.num_observed
+    out.frames = poses
+    if not any(hands.values()) or (count == 33 and any(poses.values())):
+        return
+    if not any(poses.values()) or count == 21:
+        out.frames = hands
+        return
+    shown = sum(map(bool, hands.values()))
+    sided = lambda people: len({hand.track for hand in people} & {*_SIDES}) == len(people)  # noqa: E731
+    hands = {number: people if sided(people) else [] for number, people in hands.items()}
+    odd = shown - sum(map(bool, hands.values()))
+    if any(len(people) > 1 for people in poses.values()) or 2 * odd > shown:
+        out.notes.append("the hands are left out: only those of one person are read, where the file tells their sides")
+        return
+    if odd:
+        out.notes.append(f"hands of {counted(odd, 'frame')} are left out, as their sides are unknown, or the same")
+    sides = [side for side in _SIDES if any(hand.track == side for people in hands.values() for hand in people)]
+    names = SKELETONS[BODIES[33]].joints[:33]
+    wrists = [names.index(f"{side}_wrist") for side in _SIDES]
+    if _swapped(poses, hands, wrists):
+        hands = {
+            n: [hand._replace(track=_SIDES[hand.track == "left"]) for hand in people] for n, people in hands.items()
+        }
+        sides = [side for side in _SIDES if _SIDES[side == "left"] in sides]
+        out.notes.append("hands that are called left lie at the right wrist, so left and right hands are swapped")
+    guesses = [f"{side}_{finger}" for side in sides for finger in _GUESSES]
+    kept = [k for k, name in enumerate(names) if name not in guesses]
+    joints = SKELETONS[BODIES[21]].joints
+    out.names = (*(names[k] for k in kept), *(f"{side}_hand_{joint}" for side in sides for joint in joints))
+    sure = 1.0 if out.seen & set(CONFIDENCES) else math.nan
+    for number, people in poses.items():
+        parts = [people[0].joints[kept] if people else np.full((len(kept), 3), math.nan)]
+        for side in sides:
+            hand = next((h.joints[:, :2] for h in hands[number] if h.track == side), np.full((21, 2), math.nan))
+            parts.append(np.column_stack([hand, np.full(21, sure)]))
+        out.frames[number] = [Sighting(np.concatenate(parts))] if people or hands[number] else []
+    out.notes.append(
+        f"hands are read beside the pose, whose own guesses {', '.join(guesses)} are left out "
+        f"(skeleton='{BODIES[33]}', --skeleton {BODIES[33]}, reads the pose alone)"
+    )
+
+
+def _swapped(poses: dict[int, list[Sighting]], hands: dict[int, list[Sighting]], wrists: Sequence[int]) -> bool:
+    """Whether hands lie at the other side's wrist of the pose, most of the time: their sides may be a mirror's."""
+    away = []
+    for number, people in hands.items():
+        for hand in people if poses[number] else ():
+            left, right = np.linalg.norm(poses[number][0].joints[wrists, :2] - hand.joints[0, :2], axis=-1)
+            away.append(left - right if hand.track == "left" else right - left)
+    return float(np.nanmedian([0.0, *away])) > 0 if away else False
 
 
 def _numbers(listed: Sequence[tuple[int | None, Any, str]], out: Landmarks) -> list[int]:
@@ -166,14 +254,17 @@ def _people(frame: Any, where: str, seen: set[str]) -> tuple[list[Sighting], lis
     found: list[tuple[Any, Any]] = []  # landmarks and who it is
     if isinstance(frame, dict):
         sides = frame.get("handedness", frame.get("handednesses"))
-        for key in (*_POSE, *_HANDS):
+        for keys in (_POSE, _HANDS):
+            key = next((key for key in keys if _each_person(frame.get(key))), "")
             people = _each_person(frame.get(key))
-            who = [_side(s) for s in sides] if isinstance(sides, list) and key not in _POSE[:2] else []
+            who = [_side(s) for s in sides] if isinstance(sides, list) and key not in _POSE[:3] else []
             found += zip(people, who if len(who) == len(people) else [None] * len(people), strict=True)
-            if people and key in _POSE:
-                break
         found += [(p, side) for key, side in _ONE_HAND.items() for p in _each_person(frame.get(key))]
-        if not found and not KEYS & set(frame) and not set(_POSE) & set(frame):
+        listed = frame.get("hands")
+        for hand in listed if isinstance(listed, list) else ():
+            side = next((_side(hand[k]) for k in _SAID if hand.get(k)), None) if isinstance(hand, dict) else None
+            found += [(p, side) for p in _each_person(hand)]
+        if not found and not (KEYS | SHORT_KEYS | {*_POSE}) & set(frame):
             raise FormatError(f"{where}: expected 'pose_landmarks' or 'hand_landmarks', got {_keys(frame)}")
     elif isinstance(frame, list) or frame is None:
         found = [(p, None) for p in _each_person(frame)]

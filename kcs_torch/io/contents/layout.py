@@ -33,6 +33,9 @@ BY_COUNT: dict[int, tuple[str, ...]] = {
 }
 """Skeletons by the number of joints, the usual one first."""
 
+_HANDS = "left out: skeleton='wholebody63' (--skeleton wholebody63) keeps the hands"
+_LEFT_OUT = {68: f"hands are {_HANDS}", 133: "the face is left out", 136: f"face and hands are {_HANDS}"}
+
 
 def _hands() -> list[str]:
     fingers = ("thumb", "forefinger", "middle_finger", "ring_finger", "pinky_finger")
@@ -85,6 +88,8 @@ def choose_layout(
             f"give skeleton={hint} (--skeleton)"
         )
     usual, *others = BY_COUNT[count]
+    if options.skeleton is None and count in _LEFT_OUT:
+        notes.append(_LEFT_OUT[count])
     if not others:
         return usual, names_of(usual, count)
     best, length = likeliest((usual, *others), np.stack(people[:: max(len(people) // _ENOUGH, 1)]))

@@ -46,9 +46,11 @@ def recognises_motion(probe: Probe) -> bool:
 
 def holds_motion(probe: Probe) -> bool:
     """Tell by a column z of every joint, where the joints may have MediaPipe's names."""
-    if _is_long(probe):
-        return recognises_motion(probe)
-    joints = Header.of(first_line(probe.text)).joints
+    line = first_line(probe.text)
+    long = LongHeader.of(line) if _is_long(probe) else None
+    if long is not None:
+        return long.deep
+    joints = Header.of(line).joints
     return bool(joints) and all("z" in columns for columns in joints.values())
 
 

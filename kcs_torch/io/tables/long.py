@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,10 @@ from kcs_torch.types.intake import FARTHEST
 __all__ = ["MOST", "LongHeader", "read_long"]
 
 MOST = 5e7  # coordinates of all frames, those between the file's included
-_PARTS = ("joint", "joint_name", "keypoint", "bodypart", "body_part", "part", "landmark", "node", "marker", "name")
+_PARTS = (
+    *("joint", "joint_name", "keypoint", "bodypart", "body_part", "part", "node", "marker"),
+    *("landmark", "landmark_index", "landmark_id", "name"),
+)
 _SLEAP = ["track", "frame_idx", "instance.score"]
 _UNIT = re.compile(r" \[(?P<unit>[^\]]*)\]\Z")
 
@@ -38,6 +41,7 @@ class LongHeader:
         number: the column of frame numbers.
         time: the column of times, and their unit where its name tells.
         who: the column that tells people apart.
+        kind: the column of the parts, pose, face or a hand, whose landmarks are numbered.
         twice: a column that is there twice; empty where none is.
         unit: of the coordinates, where that of x tells.
     """
@@ -48,6 +52,7 @@ class LongHeader:
     number: int | None
     time: tuple[int, str] | None
     who: int | None
+    kind: int | None
     twice: str
     unit: str
 
@@ -73,9 +78,15 @@ class LongHeader:
             header.number,
             header.time,
             header.who,
+            header.column(("type",)) if lower[joint].startswith("landmark") else None,
             next((name for name in (*held, lower[joint]) if lower.count(name) > 1), ""),
             unit["unit"] if unit else "",
         )
+
+    def name_of(self, cells: Sequence[str]) -> str:
+        """The joint's name in a row, with the part's before it where a column tells; empty where there is none."""
+        name = plain_name(cells[self.joint])
+        return name if self.kind is None or not name else f"{plain_name(cells[self.kind])}_{name}"
 
     @property
     def deep(self) -> bool:
@@ -134,7 +145,7 @@ class _Table:
                 raise FormatError(
                     f"{self.path}: row {i}: expected {width} values as in the first row, got {len(cells)}"
                 )
-            name = plain_name(cells[header.joint])
+            name = header.name_of(cells)
             if not name:
                 column = header.cells[header.joint]
                 raise FormatError(f"{self.path}: row {i}: '{column}': expected a joint's name, got an empty cell")
