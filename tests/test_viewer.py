@@ -308,6 +308,7 @@ def test_title_and_summary_are_on_the_page(result):
     page = Page(player(result))
     assert page.all("title")[0]["text"] == "SfAM: walk.npz"
     assert summarise(result) in [e["text"] for e in page.all("p")]
+    assert any("up is the camera's" in e["text"] for e in page.all("small"))
     assert {"é <b>", "made for a test"} <= {e["text"] for e in page.all("li")}
     assert Page(player(result, title="A & B")).all("title")[0]["text"] == "A & B"
     with pytest.raises(OptionError, match="title: expected text or none, got 5"):
