@@ -219,6 +219,12 @@ def test_lift_tells_who_is_seen_in_few_of_the_frames_that_are_taken(openpose_fol
         assert "visible in only" not in run(*words, "--frames", frames).stderr
 
 
+def test_all_of_one_person_have_no_file_together(openpose_folder, tmp_path):
+    words = ("-o", tmp_path / "a.html", "--person", "all", "--least-seen", 0.9, "-m", "sfam")
+    run("lift", openpose_folder, *words)
+    assert [path.name for path in tmp_path.glob("*.html")] == ["a_0.html"]
+
+
 def test_lift_one_of_several(openpose_folder, tmp_path):
     done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--person", 1, "-m", "sfam", "--json")
     (person,) = json.loads(done.stdout)["people"]

@@ -229,7 +229,7 @@ def lift(
         if least_seen is not None:
             people = _often_seen(people, least_seen, None if _is_video(tracks) else frames)
         use_one_thread()
-        together = results.together()
+        together = results.together(len(people))
         cleaned = [clean(one) for _, one in people]
         for (number, _), one in zip(people, cleaned, strict=True):
             results.check(number, one, tracks, find, together)

@@ -93,10 +93,12 @@ class Results:
             hint = f"--least-seen {FEW:g} leaves such people out"
             typer.echo(f"warning: {one_line(tracks.source)}: {say} ({hint})", err=True)
 
-    def together(self) -> list[Path]:
-        """The files that hold everybody; those that were asked for and cannot be written are told."""
+    def together(self, count: int) -> list[Path]:
+        """The files that hold all ``count`` people, none for one; those that cannot be written are told."""
         from kcs_torch.io import writer_for
 
+        if count < 2:
+            return []
         paths = [path for path in self.paths if self.everybody and writer_for(path).write_people is not None]
         if paths and self.frames == SEEN:  # each has a first frame of their own then
             say = "with --frames seen people begin at different frames"
