@@ -34,8 +34,8 @@ WITHOUT = ("auto", "parallel")
 """What may be asked for in place of intrinsics."""
 
 MAY_BE_SHARES = (
-    "coordinates lie within 0 and 1 and are taken as they are: if they are shares of the image, multiply x by its "
-    "width and y by its height, or the body is as distorted as the image is not square; else say units=..."
+    "coordinates lie within 0 and 1 and are taken as they are: if they are shares of the image, give "
+    "image_size=(width, height), or the body is as distorted as the image is not square; else say units=..."
 )
 """What is told of arrays that may be shares of an image."""
 

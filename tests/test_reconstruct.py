@@ -93,7 +93,7 @@ def test_notes_are_those_of_the_bones_that_were_found():
 
 def test_arrays_that_seem_to_be_shares_of_an_image_are_told():
     shares = (POINTS - POINTS.min()) / (POINTS.max() - POINTS.min())
-    with pytest.warns(kt.KcsWarning, match="multiply x by its width and y by its height"):
+    with pytest.warns(kt.KcsWarning, match=r"give image_size=\(width, height\), or the body"):
         reconstruct(shares, method="rigid", num_steps=1)
     reconstruct(shares, method="rigid", num_steps=1, units="m")  # a warning would be an error here
     shares[3, 4, 1] = 1.02  # a joint has left the image

@@ -1,66 +1,39 @@
-"""Landmarks as people save MediaPipe's in JSON, of several layouts."""
+"""MediaPipe's landmarks, whatever file they come from: poses, hands, and persons of both."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError, counted
-from kcs_torch.io.containers.jsonfile import as_frame_number, as_joints, as_text, entries, read_json
 from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.contents.shares import ASK, SIZE_HINT, are_shares
-from kcs_torch.io.contents.times import frames_of_times, rate_of_times, time_unit
-from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS, Skeleton
-from kcs_torch.types.image_size import told_image_size
-from kcs_torch.types.intake import FARTHEST
 from kcs_torch.types.size import METRES, short_unit
 
 __all__ = [
     "BODIES",
     "CONFIDENCES",
     "FACE_LEFT_OUT",
-    "FRAME_KEYS",
-    "KEYS",
-    "SHORT_KEYS",
+    "SIDES",
     "VISIBILITIES",
     "VISIBLE",
     "Landmarks",
     "by_visibility",
-    "nested_landmarks",
     "put_together",
-    "read_landmarks_json",
     "settle",
 ]
 
 BODIES = {33: "mediapipe33", 21: "hand21"}
-_POSE = ("pose_landmarks", "poseLandmarks", "pose", "landmarks", "landmark", "keypoints")
-_HANDS = ("hand_landmarks", "handLandmarks", "multi_hand_landmarks", "multiHandLandmarks")
-_SIDES = ("left", "right")
-_ONE_HAND = {
-    key: side
-    for side in _SIDES
-    for key in (f"{side}_hand_landmarks", f"{side}HandLandmarks", f"{side}_hand", f"{side}Hand")
-}
-_FACE = ("face_landmarks", "faceLandmarks", "face")
-KEYS = frozenset([*_POSE[:2], *_HANDS, *(key for key in _ONE_HAND if key.lower().endswith("landmarks"))])
-"""Keys that only MediaPipe's results have."""
-SHORT_KEYS = frozenset([_POSE[2], *_ONE_HAND, "hands", *_FACE]) - KEYS
-"""Keys of other files, too, where nothing like landmarks stands below them."""
+SIDES = ("left", "right")
 _GUESSES = ("pinky", "index", "thumb")
 """What a pose guesses of each hand."""
-_UNLIKE = 0.25  # share by which a rate that is told and that of the times differ if they are of other frames
-_SAID = ("handedness", "label", "side", "hand", "type")  # what a hand's side is called
-_LISTS = ("frames", "results", "data", "detections")
-FRAME_KEYS = ("frame", "frame_id", "frame_number", "frame_idx", "frame_index", "index")
 CONFIDENCES = ("confidence", "conf", "score", "likelihood", "probability", "prob", "c")
 """What a detector's own confidence in a joint is called."""
 VISIBILITIES = ("visibility", "v", "presence")
@@ -69,23 +42,13 @@ _HIDDEN = 0.3
 """Weight of a joint of visibility 0 within the image, beside 1 of one that is seen for certain. Against other
 detections of the same video, joints of visibility below 0.5 are off by 2.5 times as much as the others, not by more:
 a guess that is worth something."""
-
 VISIBLE = (
     f"visibility v tells what is hidden, not how well it is placed: it counts as confidence {_HIDDEN:g} + "
     f"{1 - _HIDDEN:g} v"
 )
 """What to say of confidences that are made of visibilities."""
-
 FACE_LEFT_OUT = "the face is left out"
 """What to say of the landmarks of a face."""
-
-_NESTED = re.compile(rb"\[(?:(?:null|\[\]),)*\[{1,2}((?:\[[^\[\]{}]*\],?)+)\]")
-
-
-def nested_landmarks(head: bytes) -> bool:
-    """Whether JSON begins with lists of numbers of which a frame, or a person of it, has 33 or 21."""
-    first = _NESTED.match(head.translate(None, b" \t\r\n"))
-    return first is not None and first[1].count(b"[") in BODIES
 
 
 @dataclass
@@ -107,27 +70,6 @@ class Landmarks:
         """Of tracks: the file's unit of length, pixels where it tells none."""
         unit = short_unit(self.unit)
         return unit if unit in METRES else "px"
-
-
-def read_landmarks_json(path: Path, body: Skeleton | None = None) -> Landmarks:
-    """Read a list of frames, an object that holds one, or a frame a line; as :func:`put_together`."""
-    data = read_json(path, lines=True)
-    out = Landmarks()
-    if isinstance(data, dict):
-        sizes = [data.get("image_size"), *([data.get(k + s) for s in ("width", "height")] for k in ("", "image_"))]
-        out.size = next(filter(None, map(told_image_size, sizes)), None)
-        out.fps = _positive(data, "fps")
-    poses: dict[int, list[Sighting]] = {}
-    hands: dict[int, list[Sighting]] = {}
-    listed = list(_frames(data, path))
-    for number, (_, frame, where) in zip(_numbers(listed, out), listed, strict=True):
-        if number in poses:
-            raise FormatError(f"{where}: expected every frame once, got frame {number} again")
-        poses[number], hands[number] = _people(frame, where, out.seen)
-    if any(isinstance(frame, dict) and any(map(frame.get, _FACE)) for _, frame, _ in listed):
-        out.notes.append(FACE_LEFT_OUT)
-    put_together(out, poses, hands, body)
-    return out
 
 
 def put_together(
@@ -154,22 +96,21 @@ def put_together(
         out.frames = hands
         return
     shown = sum(map(bool, hands.values()))
-    sided = lambda people: len({hand.track for hand in people} & {*_SIDES}) == len(people)  # noqa: E731
-    hands = {number: people if sided(people) else [] for number, people in hands.items()}
+    hands = {number: people if _sided(people) else [] for number, people in hands.items()}
     odd = shown - sum(map(bool, hands.values()))
     if any(len(people) > 1 for people in poses.values()) or 2 * odd > shown:
         out.notes.append("the hands are left out: only those of one person are read, where the file tells their sides")
         return
     if odd:
         out.notes.append(f"hands of {counted(odd, 'frame')} are left out, as their sides are unknown, or the same")
-    sides = [side for side in _SIDES if any(hand.track == side for people in hands.values() for hand in people)]
+    sides = [side for side in SIDES if any(hand.track == side for people in hands.values() for hand in people)]
     names = SKELETONS[BODIES[33]].joints[:33]
-    wrists = [names.index(f"{side}_wrist") for side in _SIDES]
+    wrists = [names.index(f"{side}_wrist") for side in SIDES]
     if _swapped(poses, hands, wrists):
         hands = {
-            n: [hand._replace(track=_SIDES[hand.track == "left"]) for hand in people] for n, people in hands.items()
+            n: [hand._replace(track=SIDES[hand.track == "left"]) for hand in people] for n, people in hands.items()
         }
-        sides = [side for side in _SIDES if _SIDES[side == "left"] in sides]
+        sides = [side for side in SIDES if SIDES[side == "left"] in sides]
         out.notes.append("hands that are called left lie at the right wrist, so left and right hands are swapped")
     guesses = [f"{side}_{finger}" for side in sides for finger in _GUESSES]
     kept = [k for k, name in enumerate(names) if name not in guesses]
@@ -188,6 +129,11 @@ def put_together(
     )
 
 
+def _sided(hands: Sequence[Sighting]) -> bool:
+    """Whether each of a frame's hands has a side of its own."""
+    return len({hand.track for hand in hands} & {*SIDES}) == len(hands)
+
+
 def _swapped(poses: dict[int, list[Sighting]], hands: dict[int, list[Sighting]], wrists: Sequence[int]) -> bool:
     """Whether hands lie at the other side's wrist of the pose, most of the time: their sides may be a mirror's."""
     away = []
@@ -196,142 +142,6 @@ def _swapped(poses: dict[int, list[Sighting]], hands: dict[int, list[Sighting]],
             left, right = np.linalg.norm(poses[number][0].joints[wrists, :2] - hand.joints[0, :2], axis=-1)
             away.append(left - right if hand.track == "left" else right - left)
     return float(np.nanmedian([0.0, *away])) > 0 if away else False
-
-
-def _numbers(listed: Sequence[tuple[int | None, Any, str]], out: Landmarks) -> list[int]:
-    """The number of each frame: as it says, else by its time, else in their order; ``out`` gets times and rate."""
-    frames = [frame if isinstance(frame, dict) else {} for _, frame, _ in listed]
-    key = next((k for frame in frames for k in frame if time_unit(k) is not None), "")
-    times = [_as_time(frame.get(key)) for frame in frames]
-    numbers = [i if number is None else number for i, (number, _, _) in enumerate(listed)]
-    by_time = len(set(times)) == len(times) > 1 and not any(map(math.isnan, times))
-    if by_time and all(number is None for number, _, _ in listed):
-        placed = frames_of_times(times, out.notes)
-        numbers = [placed[time] for time in times]
-    out.times = dict(zip(numbers, times, strict=True))
-    if out.fps is None:
-        out.fps = rate_of_times(out.times, time_unit(key) or "", out.notes)
-    else:
-        real = rate_of_times(out.times, time_unit(key) or "", [])
-        if real is None or abs(real / out.fps - 1) > _UNLIKE:  # else it is the rate of the frames that are listed
-            out.fps /= frame_numbers(sorted(numbers), [])[1]
-    return numbers
-
-
-def _as_time(value: Any) -> float:
-    """A time, NaN where it is none."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < FARTHEST:
-        return math.nan
-    return float(value)
-
-
-def _frames(data: Any, path: Path) -> Iterator[tuple[int | None, Any, str]]:
-    """The number, content and place of each frame; None where nothing numbers it."""
-    if isinstance(data, dict):
-        key = next((k for k in _LISTS if isinstance(data.get(k), list)), None)
-        if key is not None:
-            yield from _frames(data[key], path)
-        elif data and all(k.isdecimal() and len(k) < 16 for k in data):
-            yield from ((int(k), frame, f"{path}: frame {int(k)}") for k, frame in data.items())
-        else:
-            yield None, data, str(path)
-        return
-    if not isinstance(data, list):
-        raise FormatError(f"{path}: expected a list of frames with landmarks, got other JSON")
-    if _is_person(data):
-        yield None, data, str(path)
-        return
-    for i, frame in enumerate(data):
-        key = next((k for k in FRAME_KEYS if k in frame), None) if isinstance(frame, dict) else None
-        number = None if key is None else as_frame_number(frame[key])
-        if key is not None and number is None:
-            raise FormatError(f"{path}: entry {i}: '{key}': expected a whole number, got {as_text(frame[key])}")
-        yield number, frame, f"{path}: frame {i if number is None else number}"
-
-
-def _people(frame: Any, where: str, seen: set[str]) -> tuple[list[Sighting], list[Sighting]]:
-    """Poses and hands of a frame."""
-    found: list[tuple[Any, Any]] = []  # landmarks and who it is
-    if isinstance(frame, dict):
-        sides = frame.get("handedness", frame.get("handednesses"))
-        for keys in (_POSE, _HANDS):
-            key = next((key for key in keys if _each_person(frame.get(key))), "")
-            people = _each_person(frame.get(key))
-            who = [_side(s) for s in sides] if isinstance(sides, list) and key not in _POSE[:3] else []
-            found += zip(people, who if len(who) == len(people) else [None] * len(people), strict=True)
-        found += [(p, side) for key, side in _ONE_HAND.items() for p in _each_person(frame.get(key))]
-        listed = frame.get("hands")
-        for hand in listed if isinstance(listed, list) else ():
-            side = next((_side(hand[k]) for k in _SAID if hand.get(k)), None) if isinstance(hand, dict) else None
-            found += [(p, side) for p in _each_person(hand)]
-        if not found and not (KEYS | SHORT_KEYS | {*_POSE}) & set(frame):
-            raise FormatError(f"{where}: expected 'pose_landmarks' or 'hand_landmarks', got {_keys(frame)}")
-    elif isinstance(frame, list) or frame is None:
-        found = [(p, None) for p in _each_person(frame)]
-    else:
-        raise FormatError(f"{where}: expected landmarks, got {as_text(frame)}")
-    poses: list[Sighting] = []
-    hands: list[Sighting] = []
-    for landmarks, who in found:
-        joints = _joints(landmarks, where, seen)
-        if len(joints) not in BODIES:
-            raise FormatError(f"{where}: expected 33 landmarks of a pose or 21 of a hand, got {len(joints)}")
-        (poses if len(joints) == 33 else hands).append(Sighting(joints, who))
-    return poses, hands
-
-
-def _is_person(value: Any) -> bool:
-    """Whether this is the list of one person's landmarks."""
-    first = value[0] if isinstance(value, list) and value else None
-    if isinstance(first, dict):
-        return "x" in first and "y" in first
-    return isinstance(first, list) and len(first) > 1 and all(isinstance(v, (int, float)) for v in first)
-
-
-def _each_person(value: Any) -> list[Any]:
-    """The landmarks of each person; nobody where there is nothing."""
-    value = _inside(value)
-    if not value:
-        return []
-    if not isinstance(value, list) or _is_person(value):
-        return [value]
-    return [inside for person in value if (inside := _inside(person))]
-
-
-def _inside(value: Any) -> Any:
-    """The landmarks in MediaPipe's messages, which hold them in an object."""
-    if isinstance(value, dict):
-        return next((value[k] for k in ("landmark", "landmarks") if k in value), value)
-    return value
-
-
-def _joints(landmarks: Any, where: str, seen: set[str]) -> NDArray[np.float64]:
-    """x, y, confidence or visibility of each landmark; NaN where it is not given. ``seen`` gets what it is called."""
-    if isinstance(landmarks, dict):  # by name
-        by_name = {str(k).lower().replace(" ", "_"): v for k, v in landmarks.items()}
-        body = next((b for b in map(SKELETONS.get, BODIES.values()) if b and set(by_name) & set(b.joints)), None)
-        if body is None:
-            raise FormatError(f"{where}: expected landmarks, got an object with {_keys(landmarks)}")
-        landmarks = [by_name.get(j, {"x": None, "y": None}) for j in body.joints[: body.num_observed]]
-    if not isinstance(landmarks, list) or not landmarks:
-        raise FormatError(f"{where}: expected a list of landmarks, got {as_text(landmarks)}")
-    if isinstance(landmarks[0], dict):
-        rows = []
-        for here, mark in entries(landmarks, where):
-            if "x" not in mark or "y" not in mark:
-                raise FormatError(f"{here}: expected a landmark with 'x' and 'y', got {_keys(mark)}")
-            key = next((k for k in (*CONFIDENCES, *VISIBILITIES) if mark.get(k) is not None), "")
-            seen |= {key} - {""}
-            rows.append([mark["x"], mark["y"], mark.get(key)])
-        return as_joints(rows, where)
-    joints = as_joints(landmarks, where)
-    width = len(landmarks[0]) if isinstance(landmarks[0], list) else 3
-    seen.add("visibility")
-    if width > 3:  # x, y, z, visibility
-        joints[:, 2] = as_joints([row[2:4] for row in landmarks], where)[:, 1]
-    elif width == 2:
-        joints[:, 2] = math.nan
-    return joints
 
 
 def by_visibility(visibility: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -381,26 +191,3 @@ def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> N
             joints[:, 2] = np.where(outside, weight, by_visibility(weight))
         if small and size is not None:
             joints[:, :2] *= size
-
-
-def _side(value: Any) -> Any:
-    """'left' or 'right' as MediaPipe's classifications say it, however deep they are."""
-    for _ in range(4):
-        if isinstance(value, list) and value:
-            value = value[0]
-        elif isinstance(value, dict):
-            keys = ("category_name", "categoryName", "label", "display_name", "classification")
-            value = next((value[k] for k in keys if value.get(k)), None)
-    return value.lower() if isinstance(value, str) and value.lower() in ("left", "right") else None
-
-
-def _positive(data: dict[str, Any], key: str) -> float | None:
-    value = data.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < FARTHEST:
-        return None
-    return float(value)
-
-
-def _keys(value: dict[str, Any]) -> str:
-    shown = ", ".join(as_text(k) for k in list(value)[:6])
-    return f"the keys {shown}" if shown else "no keys"

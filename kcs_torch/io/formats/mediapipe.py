@@ -7,7 +7,8 @@ from pathlib import Path
 from kcs_torch.errors import FormatError
 from kcs_torch.io.containers.jsonfile import outline
 from kcs_torch.io.contents.frames import by_number
-from kcs_torch.io.contents.landmarks import BODIES, KEYS, SHORT_KEYS, nested_landmarks, read_landmarks_json, settle
+from kcs_torch.io.contents.landmarks import BODIES, settle
+from kcs_torch.io.contents.landmarks_json import KEYS, SHORT_KEYS, nested_landmarks, read_landmarks_json
 from kcs_torch.io.contents.people import people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.io.tables.landmark_tables import frame_shape, npy_shape, read_csv, read_npy, table_kind

@@ -70,9 +70,8 @@ def read(path: Path, options: Options) -> list[Tracks]:
     units = short_unit(file.text("units")) if "units" in file else "px"
     notes = _json(file, "notes", list) if "notes" in file else []
     size = _size_in(file)
-    written = "skeleton" in file  # by this library, with coordinates as they were
-    shares = units == "px" and points.shape[-1] == 2 and are_shares(points)
-    if shares:
+    written = "skeleton" in file  # by this library
+    if units == "px" and points.shape[-1] == 2 and are_shares(points):
         points = in_pixels(points, options.size_of(size), notes)
     tracks = build_tracks(
         points,
